@@ -33,7 +33,7 @@ pub use close::{
 pub use exact::conv::ExactConv;
 pub use exact::double::add_products;
 pub use exact::requantise::{LIMIT, Requantise};
-pub use exact::{butterflies, coefficients, hidden, jacobi, mixing, smooth};
+pub use exact::{butterflies, coefficients, hidden, jacobi, mixing, scatter, smooth};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};
 pub use simd::{Isa, Scalar, Simd, Simd as Instructions, UnknownIsa, Work};

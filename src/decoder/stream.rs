@@ -398,7 +398,7 @@ impl Decoder {
         self.level.unwrap_or(header.top).clamp(header.base, header.top)
     }
 
-    pub(super) fn log(&self) -> Log {
+    pub(crate) fn log(&self) -> Log {
         self.log.clone().unwrap_or(Log::off())
     }
 

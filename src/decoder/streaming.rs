@@ -72,7 +72,7 @@ impl<'b> Decoding<'b> {
     /// What the next frame of a sequence is predicted from. `None` if this is no frame, or it was taken before.
     pub(crate) fn take_previous(&mut self) -> Option<Previous> {
         match &mut self.state {
-            State::Transform(decoding) => decoding.previous(),
+            State::Transform(decoding) => decoding.previous(&self.decoder.log()),
             _ => None,
         }
     }

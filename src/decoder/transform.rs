@@ -71,9 +71,12 @@ impl<'b> Transform<'b> {
     }
 
     /// What the next frame is predicted from.
-    pub(super) fn previous(&mut self) -> Option<Previous> {
+    pub(super) fn previous(&mut self, log: &Log) -> Option<Previous> {
         let history = self.history.take()?;
-        Some(Previous::new(&self.reached.as_ref()?.octree, history))
+        let Reached { octree, level, .. } = self.reached.as_ref()?;
+        let made = || Ok(Previous::new(octree, history));
+        log.step("levels for the next frame", octree.level(*level).len(), "voxels", made)
+            .ok()
     }
 
     pub(super) fn push(&mut self, bytes: &[u8]) {
@@ -312,9 +315,16 @@ impl Growing<'_> {
         })?;
         self.decoder.cancel().check()?;
         let guides = match self.inter {
-            Some(inter) => (1..=depth)
-                .map(|n| inter.colours(octree, n, depth))
-                .collect::<Result<Vec<_>>>()?,
+            Some(inter) => log.step(
+                format!("predicted colours of levels 0 to {depth}"),
+                count,
+                "voxels",
+                || {
+                    (1..=depth)
+                        .map(|n| inter.colours(octree, n, depth))
+                        .collect::<Result<Vec<_>>>()
+                },
+            )?,
             None => Vec::new(),
         };
         let guides: Vec<colour::Guide> = guides.iter().map(ColourGuide::guide).collect();
@@ -369,7 +379,12 @@ impl Growing<'_> {
         let map = log.step(format!("neighbours of level {n}"), count, "voxels", || {
             Ok(octree.child_siblings(n - 1, above_map))
         })?;
-        let guide = self.inter.map(|inter| inter.colours(octree, n, n)).transpose()?;
+        let guide = self.inter.map(|inter| {
+            log.step(format!("predicted colours of level {n}"), count, "voxels", || {
+                inter.colours(octree, n, n)
+            })
+        });
+        let guide = guide.transpose()?;
         let name = self.named(format!("colours of level {n}"), n);
         let coloured = log.step(name, count, "voxels", || {
             let slice = header.colour_slice() as usize;

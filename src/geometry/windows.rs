@@ -1,4 +1,4 @@
-//! What is around the nodes of a brick.
+//! What is around the nodes of a brick: where their children find their neighbours (`docs/format.md`, clause 2.4).
 
 /// Cells whose x is 0, and below 3, and the same of y, by `x + 4y + 16z`.
 const X: [u64; 2] = [0x1111_1111_1111_1111, 0x7777_7777_7777_7777];

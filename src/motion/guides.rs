@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
+use b2p_kernels::Isa;
 use rayon::prelude::*;
 
 use super::bricks::{Bricks, Near, Windows};
@@ -91,10 +92,10 @@ impl Inter {
     ///
     /// # Errors
     /// [`Error::Malformed`] if the motion is damaged.
-    pub fn new(previous: Arc<Previous>, motion: &[&[u8]], base: u8, top: u8) -> Result<Self> {
+    pub fn new(isa: Isa, previous: Arc<Previous>, motion: &[&[u8]], [base, top]: [u8; 2]) -> Result<Self> {
         let (head, first) = Head::parse(motion.first().copied().unwrap_or_default(), base, top)?;
         let (warped, first) = match head.warped {
-            true => Self::warped(&previous, head, base, first)?,
+            true => Self::warped(isa, &previous, head, base, first)?,
             false => (None, first),
         };
         let mut sections = vec![first.to_vec()];
@@ -113,6 +114,7 @@ impl Inter {
 
     /// Reads the lattice of a warped frame, and makes what it makes of the previous frame.
     fn warped<'a>(
+        isa: Isa,
         previous: &Previous,
         head: Head,
         base: u8,
@@ -124,7 +126,7 @@ impl Inter {
         let made = || {
             let mut lattice = Lattice::of(&source.nodes(top, level), level);
             lattice.read(words, "lattice", |vector| head.check(vector))?;
-            Scattered::new(source, &lattice, [top, head.unit_level], head.smooth).warped(least)
+            Scattered::new(isa, source, &lattice, [top, head.unit_level], head.smooth).warped(least)
         };
         let warped = made().map_err(|error| of_level(error, base))?;
         Ok((Some(Arc::new(warped)), rest))

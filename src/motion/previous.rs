@@ -71,6 +71,11 @@ impl Previous {
             .ok_or_else(|| Error::Usage(format!("level {level} of the previous frame was not decoded")))
     }
 
+    /// How many voxels the finest level has.
+    pub fn voxels(&self) -> usize {
+        self.levels.last().map_or(0, |level| level.values.len())
+    }
+
     /// Bytes of memory per voxel at most.
     pub const fn bytes_per_voxel() -> usize {
         Bricks::bytes_per_voxel() + size_of::<Ycc>()

@@ -10,6 +10,7 @@ mod touched;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use b2p_kernels::Isa;
 use rayon::prelude::*;
 
 use super::bricks::Bricks;
@@ -58,6 +59,7 @@ pub struct WarpedLevel {
 
 /// The voxels of a frame where they have moved to.
 pub struct Scattered<'a> {
+    isa: Isa,
     top: u8,
     values: &'a [Ycc],
     places: Vec<Place>,
@@ -75,10 +77,11 @@ struct Tiles {
 impl<'a> Scattered<'a> {
     /// Moves the voxels of `previous`, of level `top`, by a lattice with vectors in voxels of level `unit`. If `smooth`,
     /// they start from the surface that the voxels around them tell of.
-    pub fn new(previous: &'a PreviousLevel, lattice: &Lattice, [top, unit]: [u8; 2], smooth: bool) -> Self {
+    pub fn new(isa: Isa, previous: &'a PreviousLevel, lattice: &Lattice, [top, unit]: [u8; 2], smooth: bool) -> Self {
         let places = places(previous, lattice, [top, unit], smooth);
         let touched = Touched::new(&places, top);
         Scattered {
+            isa,
             top,
             values: &previous.values,
             places,
@@ -158,11 +161,14 @@ impl<'a> Scattered<'a> {
                 }
                 let voxels = || {
                     let voxels = runs.iter().flat_map(|run| self.touched.voxels(run));
-                    voxels.map(|voxel| (self.places[voxel], self.values[voxel]))
+                    voxels.map(|voxel| {
+                        let [y, co, cg] = self.values[voxel];
+                        (self.places[voxel], [1, y, co, cg, 1, y, co, cg])
+                    })
                 };
                 let number = runs.iter().map(|run| run.range.len()).sum();
                 cells.clear();
-                grid.near(runs[0].tile, self.top, number, voxels, cells);
+                grid.near(self.isa, runs[0].tile, self.top, number, voxels, cells);
                 count.fetch_add(cells.len(), Ordering::Relaxed);
                 take(&mut made, cells);
             }

@@ -188,7 +188,10 @@ impl SequenceDecoder {
                     // What is wrong with the motion of finer levels is theirs.
                     let motion = &motion[..=usize::from(level - header.base)];
                     let previous = Arc::clone(&last.previous);
-                    Some(Inter::new(previous, motion, header.base, header.top)?)
+                    let (isa, levels) = (self.decoder.isa(), [header.base, header.top]);
+                    let voxels = previous.voxels();
+                    let inter = || Inter::new(isa, previous, motion, levels);
+                    Some(self.decoder.log().step("motion", voxels, "voxels", inter)?)
                 }
             };
             let decoder = self.decoder.clone().with_level(level);

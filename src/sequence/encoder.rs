@@ -402,11 +402,11 @@ fn finished(
     let coded = frame_of(&header, &stream, motion, ticks)?;
     let mut next = None;
     if follows || !motion.is_empty() {
+        let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
         let inter = previous.map(|previous| {
             let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
-            Inter::new(Arc::clone(previous), &motion, header.base, header.top)
+            Inter::new(decoder.isa(), Arc::clone(previous), &motion, [header.base, header.top])
         });
-        let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
         let mut decoding = decoder.start_frame(stream, inter.transpose()?);
         decoding.finish()?;
         next = decoding.take_previous().map(Arc::new);

@@ -265,6 +265,15 @@ impl Group<'_> {
         self.frames[at].kind == FrameKind::Whole
     }
 
+    /// Whether the frame at this place in the group is predicted from the previous one as a smooth field warps it
+    /// (`docs/format.md`, clause 17.10). Not if its motion is damaged.
+    ///
+    /// # Panics
+    /// If the group has no such frame.
+    pub fn is_warped(&self, at: usize) -> bool {
+        !self.is_whole(at) && self.head(at).is_ok_and(|head| head.warped)
+    }
+
     /// The header of the frame at this place in the group, as if it was a stream of its own.
     ///
     /// # Panics
@@ -301,13 +310,16 @@ impl Group<'_> {
     /// # Errors
     /// [`Error::Malformed`] if the frame's motion is damaged.
     pub(super) fn reference_level(&self, at: usize) -> Result<u8> {
+        Ok(self.head(at)?.reference_level)
+    }
+
+    /// The head of the motion of the predicted frame at this place in the group.
+    fn head(&self, at: usize) -> Result<Head> {
         let frame = &self.frames[at];
         let motion = frame.levels.first().map_or(0, |level| level.motion as usize);
         let bytes = &self.bytes[frame.offset as usize..][..motion];
-        match Head::parse(bytes, self.common.base, self.common.top) {
-            Ok((head, _)) => Ok(head.reference_level),
-            Err(error) => Err(self.in_frame(at, error)),
-        }
+        let head = Head::parse(bytes, self.common.base, self.common.top);
+        head.map(|(head, _)| head).map_err(|error| self.in_frame(at, error))
     }
 
     /// An error in the stream or in the motion of a frame, as one of the sequence.

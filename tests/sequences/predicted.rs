@@ -3,7 +3,7 @@
 use b2p::cloud::ColouredVoxels;
 use b2p::encoder::transform::{GeometryTarget, QualityTarget};
 use b2p::geometry::{Voxels, morton};
-use b2p::{Decoder, Placement, SequenceDecoder, SequenceEncoder};
+use b2p::{Decoder, Motion, Placement, SequenceDecoder, SequenceEncoder};
 
 use super::common::Ball;
 use super::{Frame, ball, encoder, frame, moving, reader};
@@ -158,6 +158,19 @@ fn a_moved_surface_of_other_sample_points_takes_a_fraction_of_the_bits() {
         let cloud = cloud(number);
         let far = cloud.voxels.keys().iter().filter(|key| !near(key)).count();
         assert!(1000 * far <= cloud.voxels.len(), "frame {number}: {far} voxels");
+    }
+}
+
+#[test]
+fn a_frame_says_whether_it_is_warped() {
+    for motion in [Motion::Warped, Motion::Parts, Motion::Blocks] {
+        let encoder = SequenceEncoder::new().with_levels(4..=7).with_motion(motion);
+        let bytes = encoder.encode(3, |frame| Ok(still(frame)), |_| {}).expect("a sequence");
+        let sequence = reader(&bytes);
+        let group = sequence.group(0).expect("a group");
+        let kinds: Vec<_> = (0..3).map(|at| (group.is_whole(at), group.is_warped(at))).collect();
+        let warped = motion == Motion::Warped;
+        assert_eq!(kinds, [(true, false), (false, warped), (false, warped)], "{motion:?}");
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use b2p::{Limits, SequenceReader};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -52,6 +53,13 @@ fn a_folder_a_pattern_and_a_list_of_files_make_the_same_sequence() {
     }
     let info: Value = serde_json::from_str(&succeeds(at, &["info", "a.b2p", "--json"])).unwrap();
     assert_eq!(info["frames"], 6, "{info}");
+    let sequence = SequenceReader::new(bytes(at, "a.b2p"), &Limits::default()).unwrap();
+    for (number, said) in info["groups"].as_array().unwrap().iter().enumerate() {
+        let group = sequence.group(number).unwrap();
+        let count = |is: &dyn Fn(usize) -> bool| (0..group.len()).filter(|at| is(*at)).count();
+        assert_eq!(said["whole"], count(&|at| group.is_whole(at)), "{info}");
+        assert_eq!(said["warped"], count(&|at| group.is_warped(at)), "{info}");
+    }
     succeeds(at, &["check", "a.b2p"]);
 }
 

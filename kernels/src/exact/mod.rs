@@ -24,5 +24,6 @@ pub(crate) mod norms;
 pub(crate) mod peak;
 pub(crate) mod reference;
 pub(crate) mod requantise;
+pub mod scatter;
 pub mod smooth;
 mod winograd;

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use b2p_kernels::Isa;
+
 use super::choice::Weights;
 use super::predicted::{Plan, Target};
 use super::warp::{LATTICE_UNIT, Warp};
@@ -49,7 +51,8 @@ impl Frame<'_> {
             return moved();
         }
         let warped = || {
-            let warp = Warp::new(self.previous, self.octree, self.truth, self.top);
+            let isa = self.options.isa.unwrap_or_else(Isa::detect);
+            let warp = Warp::new(isa, self.previous, self.octree, self.truth, self.top);
             warp.map(|warp| self.candidate(Some(warp))).transpose()
         };
         if motion == Motion::Warped {

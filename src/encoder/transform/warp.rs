@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use b2p_kernels::Isa;
+
 use super::field;
 use crate::colour::Truth;
 use crate::geometry::{Octree, Voxels};
@@ -25,7 +27,7 @@ pub(super) struct Warp {
 
 impl Warp {
     /// Warps the previous frame onto this one. `None` if that cannot be coded.
-    pub fn new(previous: &Previous, octree: &Octree, truth: &Truth, top: u8) -> Option<Self> {
+    pub fn new(isa: Isa, previous: &Previous, octree: &Octree, truth: &Truth, top: u8) -> Option<Self> {
         let source = previous.level(top)?;
         let level = top.checked_sub(LATTICE_DEPTH)?;
         let unit = top + LATTICE_UNIT;
@@ -39,7 +41,7 @@ impl Warp {
             values: truth.level(top),
         };
         let lattice = field::estimate(&from, &to, [level, top], unit);
-        let scattered = Scattered::new(source, &lattice, [top, unit], true);
+        let scattered = Scattered::new(isa, source, &lattice, [top, unit], true);
         let least = scattered.least((to.keys.len() as f32 * MORE_VOXELS) as usize).ok()?;
         let warped = scattered.warped(least).ok()?;
         let (keys, values) = warped.finest();

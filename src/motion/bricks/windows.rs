@@ -3,6 +3,29 @@
 use super::{Bricks, NOWHERE};
 use crate::geometry::{ones, windows};
 
+/// Of each of the 3³ tiles around one, the bricks that are next to it.
+const SEEN: [u8; 27] = {
+    let mut seen = [0; 27];
+    let mut i = 0;
+    while i < 27 {
+        let mut octant = 0;
+        while octant < 8 {
+            let steps = [(i % 3, octant & 1), (i / 3 % 3, octant >> 1 & 1), (i / 9, octant >> 2)];
+            let mut is_next = true;
+            let mut axis = 0;
+            while axis < 3 {
+                let (step, half) = steps[axis];
+                is_next &= step == 1 || (step == 0 && half == 1) || (step == 2 && half == 0);
+                axis += 1;
+            }
+            seen[i] |= (is_next as u8) << octant;
+            octant += 1;
+        }
+        i += 1;
+    }
+    seen
+};
+
 /// Windows of nodes of 2³ cells: the 4³ cells from one before the node on, as a mask by `x + 4y + 16z`. A brick has eight
 /// nodes. It is fast to go from a brick to the next in the order of keys.
 pub struct Windows<'a, const N: usize, C> {
@@ -57,14 +80,17 @@ impl<'a, const N: usize, C: Fn(usize) -> [u64; N]> Windows<'a, N, C> {
                 continue;
             };
             let tile = &self.bricks.tiles[tile];
-            for (brick, octant) in (tile.first as usize..).zip(ones(tile.there)) {
-                let at = [0, 1, 2].map(|axis| 2 * step[axis] + (octant as i32 >> axis & 1) - 1);
-                if at.iter().all(|x| (0..4).contains(x)) {
-                    let at = (at[0] + 4 * at[1] + 16 * at[2]) as usize & 63;
-                    let cells = (self.cells)(brick);
-                    for (block, cells) in self.block.iter_mut().zip(cells) {
-                        block[at] = cells;
-                    }
+            // The first of its bricks in the block, and those that are there.
+            let first = step
+                .iter()
+                .zip([1, 4, 16])
+                .map(|(step, by)| by * (2 * step - 1))
+                .sum::<i32>();
+            for octant in ones(tile.there & SEEN[i as usize]) {
+                let at = first + [0, 1, 4, 5, 16, 17, 20, 21][octant & 7];
+                let cells = (self.cells)(tile.number(octant));
+                for (block, cells) in self.block.iter_mut().zip(cells) {
+                    block[at as usize & 63] = cells;
                 }
             }
         }

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::geometry::{Octree, Voxels};
+use b2p_kernels::Isa;
 use proptest::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -114,7 +115,7 @@ proptest! {
             sum as i16 + shift[axis]
         }));
         let expected = plain(&previous, &voxels, &lattice, [top, unit], smooth);
-        match Scattered::new(&previous, &lattice, [top, unit], smooth).warped(least) {
+        match Scattered::new(Isa::detect(), &previous, &lattice, [top, unit], smooth).warped(least) {
             Err(error) => {
                 prop_assert_eq!(error.clause(), Some(TOO_MANY));
                 prop_assert!(expected.len() > 4 * voxels.len() + 64);
@@ -148,14 +149,26 @@ proptest! {
 fn a_lattice_without_motion_leaves_all_as_it_is_and_whole_steps_move_it() {
     let (previous, voxels) = frame(5, (0..4000).map(|i| i * 7 % 32_768).collect());
     for smooth in [false, true] {
-        let still = Scattered::new(&previous, &lattice(&voxels, 3, |_| [0; 3]), [5, 7], smooth)
-            .warped(128)
-            .unwrap();
+        let still = Scattered::new(
+            Isa::detect(),
+            &previous,
+            &lattice(&voxels, 3, |_| [0; 3]),
+            [5, 7],
+            smooth,
+        )
+        .warped(128)
+        .unwrap();
         assert_eq!(keys(still.at(5).unwrap()), voxels.keys());
         assert_eq!(still.at(5).unwrap().near.values, previous.values);
-        let moved = Scattered::new(&previous, &lattice(&voxels, 3, |_| [4, -8, 0]), [5, 7], smooth)
-            .warped(128)
-            .unwrap();
+        let moved = Scattered::new(
+            Isa::detect(),
+            &previous,
+            &lattice(&voxels, 3, |_| [4, -8, 0]),
+            [5, 7],
+            smooth,
+        )
+        .warped(128)
+        .unwrap();
         let (cells, colours) = moved.finest();
         for (key, colour) in cells.iter().zip(colours) {
             let [x, y, z] = morton::decode(*key).map(|x| x as i32);
@@ -173,7 +186,7 @@ fn voxels_that_all_fall_apart_are_refused_by_their_number() {
     // An eighth of the weight for each of eight cells is less than makes them near; two axes give four of a quarter.
     assert!(
         keys(
-            Scattered::new(&previous, &apart, [6, 8], false)
+            Scattered::new(Isa::detect(), &previous, &apart, [6, 8], false)
                 .warped(128)
                 .unwrap()
                 .at(6)
@@ -183,7 +196,7 @@ fn voxels_that_all_fall_apart_are_refused_by_their_number() {
     );
     let apart = lattice(&voxels, 4, |_| [2, 2, 0]);
     let near = keys(
-        Scattered::new(&previous, &apart, [6, 8], false)
+        Scattered::new(Isa::detect(), &previous, &apart, [6, 8], false)
             .warped(128)
             .unwrap()
             .at(6)

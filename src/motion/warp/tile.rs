@@ -1,161 +1,165 @@
 //! What voxels give to the cells of a tile (`docs/format.md`, clauses 17.10.4 and 17.10.5).
 
+use b2p_kernels::scatter::{NUMBERS, PARTS, scatter};
+use b2p_kernels::{Instructions, Isa, Work};
+
 use super::NEAR;
 use super::levels::Cell;
 use super::places::Place;
-use crate::colour::Ycc;
-use crate::geometry::{morton, ones};
+use crate::geometry::morton;
 
 /// Levels of cells of a tile, and cells along its sides.
 pub(super) const TILE: u32 = 3;
-pub(super) const SIDE: i32 = 1 << TILE;
+const SIDE: i32 = 1 << TILE;
 pub(super) const CELLS: usize = 1 << (3 * TILE);
 
-/// Bits of a coordinate in a tile, spread as in a Morton key.
-const SPREAD: [usize; SIDE as usize] = [0, 1, 8, 9, 64, 65, 72, 73];
+/// From a cell to the next one along each axis. There is a cell more on each side of a tile, which is not looked at.
+const STEPS: [usize; 3] = [1, SIDE as usize + 2, (SIDE as usize + 2) * (SIDE as usize + 2)];
+/// All cells.
+const ALL: usize = STEPS[1] * STEPS[2];
 
-/// The cells of a tile, without sums but while one is made.
-pub(super) struct Grid {
-    narrow: Vec<[i32; 4]>,
-    wide: Vec<[i64; 4]>,
-}
-
-impl Grid {
-    pub fn new() -> Self {
-        Grid {
-            narrow: vec![[0; 4]; CELLS],
-            wide: vec![[0; 4]; CELLS],
+/// Of each Morton key in a tile the place of its cell.
+const PLACES: [u16; CELLS] = {
+    let mut places = [0; CELLS];
+    let mut key = 0;
+    while key < CELLS {
+        let mut axis = 0;
+        while axis < 3 {
+            let x = (key >> axis & 1) + 2 * (key >> (axis + 3) & 1) + 4 * (key >> (axis + 6) & 1);
+            places[key] += ((x + 1) * STEPS[axis]) as u16;
+            axis += 1;
         }
+        key += 1;
     }
-
-    /// Adds the near cells of the tile with key `tile` to `cells`, in the order of keys: those of `number` voxels.
-    pub fn near<I>(&mut self, tile: u64, top: u8, number: usize, voxels: impl Fn() -> I, cells: &mut Vec<Cell>)
-    where
-        I: Iterator<Item = (Place, Ycc)>,
-    {
-        let corner = morton::decode(tile).map(|x| x as i32 * SIDE);
-        // A small cube is less than a tile.
-        let side = SIDE.min(1 << top);
-        if number < FEW {
-            let given = sums(&mut self.narrow, voxels(), corner, side);
-            if near(&mut self.narrow, given, tile, cells) < LIGHT {
-                return;
-            }
-            cells.clear();
-        }
-        let given = sums(&mut self.wide, voxels(), corner, side);
-        near(&mut self.wide, given, tile, cells);
-    }
-}
-
-/// Sums of weights, and of weighted Y, Co and Cg.
-trait Sums: Copy + Default {
-    fn add(&mut self, weight: i32, value: Ycc);
-
-    fn wide(self) -> [i64; 4];
-}
-
-impl Sums for [i32; 4] {
-    #[inline(always)]
-    fn add(&mut self, weight: i32, value: Ycc) {
-        // What leaves 32 bits is found by the weight, and added again in 64.
-        let value = [1, value[0], value[1], value[2]].map(i32::from);
-        // Both have 16 bits, of which products are faster.
-        let weight = i32::from(weight as i16);
-        for (sum, value) in self.iter_mut().zip(value) {
-            *sum = sum.wrapping_add(weight * value);
-        }
-    }
-
-    #[inline(always)]
-    fn wide(self) -> [i64; 4] {
-        self.map(i64::from)
-    }
-}
-
-impl Sums for [i64; 4] {
-    fn add(&mut self, weight: i32, value: Ycc) {
-        let value = [1, i64::from(value[0]), i64::from(value[1]), i64::from(value[2])];
-        for (sum, value) in self.iter_mut().zip(value) {
-            *sum += i64::from(weight) * value;
-        }
-    }
-
-    fn wide(self) -> [i64; 4] {
-        self
-    }
-}
+    places
+};
 
 /// Fewer voxels than these cannot make the weight of a cell leave 32 bits.
 const FEW: usize = 1 << 18;
 /// Sums of cells that have less weight than this have not left 32 bits: values have at most 16.
 const LIGHT: u64 = 1 << 16;
 
-/// A bit for each cell of a tile that was given something.
-type Given = [u64; CELLS / 64];
+/// 1 and the three values of a voxel, twice.
+pub(super) type Value = [i16; 2 * NUMBERS];
 
-/// Adds up what the voxels at these places give to the cells of the tile at `corner`, of which `side` along each axis are
-/// in the cube.
-#[inline(always)]
-fn sums<S: Sums>(grid: &mut [S], voxels: impl Iterator<Item = (Place, Ycc)>, corner: [i32; 3], side: i32) -> Given {
-    let Ok(grid) = <&mut [S; CELLS]>::try_from(grid) else {
-        unreachable!("a tile has {CELLS} cells")
-    };
-    let mut given = [0u64; CELLS / 64];
-    for (place, value) in voxels {
-        let low = [0, 1, 2].map(|axis| (place[axis] >> 4) - corner[axis]);
-        let high = place.map(|x| x & 15);
-        // Of each axis, what both cells are in the number of a cell.
-        let cells = [0, 1, 2].map(|axis| [low[axis], low[axis] + 1].map(|x| SPREAD[x as usize & 7] << axis));
-        let mut give = |x: usize, y: usize, z: usize, weight: i32| {
-            let cell = (cells[0][x] | cells[1][y] | cells[2][z]) & (CELLS - 1);
-            grid[cell].add(weight, value);
-            given[cell >> 6] |= 1 << (cell & 63);
-        };
-        let mut give_both = |y: usize, z: usize, weight: i32| {
-            if (0..side - 1).contains(&low[0]) {
-                give(0, y, z, weight * (16 - high[0]));
-                give(1, y, z, weight * high[0]);
-            } else if (0..side).contains(&low[0]) {
-                give(0, y, z, weight * (16 - high[0]));
-            } else if low[0] == -1 && high[0] > 0 {
-                give(1, y, z, weight * high[0]);
-            }
-        };
-        let has = |axis: usize, step: i32| (0..side).contains(&(low[axis] + step)) && (step == 0 || high[axis] > 0);
-        if has(1, 0) && has(2, 0) {
-            give_both(0, 0, (16 - high[1]) * (16 - high[2]));
-        }
-        if has(1, 1) && has(2, 0) {
-            give_both(1, 0, high[1] * (16 - high[2]));
-        }
-        if has(1, 0) && has(2, 1) {
-            give_both(0, 1, (16 - high[1]) * high[2]);
-        }
-        if has(1, 1) && has(2, 1) {
-            give_both(1, 1, high[1] * high[2]);
-        }
-    }
-    given
+/// The cells of a tile, each with the sums of weights, and of weighted Y, Co and Cg.
+pub(super) struct Grid {
+    narrow: Vec<i32>,
+    wide: Vec<[i64; NUMBERS]>,
 }
 
-/// Adds the near cells of a tile to `cells`, of which those that were `given` something are looked at. `grid` is left
-/// without sums. Returns the largest weight.
-fn near<S: Sums>(grid: &mut [S], given: Given, tile: u64, cells: &mut Vec<Cell>) -> u64 {
-    let mut most = 0;
-    for (word, given) in given.into_iter().enumerate() {
-        for bit in ones(given) {
-            let [weight, sums @ ..] = std::mem::take(&mut grid[word << 6 | bit]).wide();
-            let weight = weight as u64;
-            most = most.max(weight);
-            if weight >= NEAR {
-                cells.push(Cell {
-                    key: tile << (3 * TILE) | (word << 6 | bit) as u64,
-                    voxel: false,
-                    weight,
-                    sums,
-                });
+impl Grid {
+    pub fn new() -> Self {
+        Grid {
+            narrow: vec![0; NUMBERS * ALL],
+            wide: Vec::new(),
+        }
+    }
+
+    /// Adds the near cells of the tile with key `tile` to `cells`, in the order of keys. `voxels` are the `number` ones that
+    /// give something to it; none is farther from it than a cell.
+    pub fn near<I>(
+        &mut self,
+        isa: Isa,
+        tile: u64,
+        top: u8,
+        number: usize,
+        voxels: impl Fn() -> I,
+        cells: &mut Vec<Cell>,
+    ) where
+        I: Iterator<Item = (Place, Value)>,
+    {
+        let corner = morton::decode(tile).map(|x| x as i32 * SIDE);
+        // A small cube is less than a tile.
+        let keys = CELLS.min(1 << (3 * u32::from(top)));
+        if number < FEW {
+            self.narrow.fill(0);
+            let (voxels, sums) = (voxels(), &mut self.narrow);
+            isa.run(Narrow { corner, voxels, sums });
+            let sums = |place: usize| [0, 1, 2, 3].map(|i| i64::from(self.narrow[NUMBERS * place + i]));
+            if near(keys, tile, |place| self.narrow[NUMBERS * place].into(), sums, cells) < LIGHT {
+                return;
             }
+            cells.clear();
+        }
+        self.wide.clear();
+        self.wide.resize(ALL, [0; NUMBERS]);
+        for (place, value) in voxels() {
+            add(&mut self.wide, corner, place, value);
+        }
+        near(keys, tile, |place| self.wide[place][0], |place| self.wide[place], cells);
+    }
+}
+
+/// The place of the lowest cell that a voxel gives something to, and how far it is beyond that along each axis.
+#[inline(always)]
+fn lowest(corner: [i32; 3], place: Place) -> (usize, [i32; 3]) {
+    let along = |axis: usize| ((place[axis] >> 4) - corner[axis] + 1) as usize * STEPS[axis];
+    (along(0) + along(1) + along(2), place.map(|x| x & (PARTS - 1)))
+}
+
+/// Adds up what voxels give to cells, in 32 bits.
+struct Narrow<'a, I> {
+    corner: [i32; 3],
+    voxels: I,
+    sums: &'a mut [i32],
+}
+
+impl<I: Iterator<Item = (Place, Value)>> Work for Narrow<'_, I> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Instructions>(self, simd: S) {
+        let steps = [STEPS[1], STEPS[2]].map(|step| NUMBERS * step);
+        for (place, value) in self.voxels {
+            let (first, high) = lowest(self.corner, place);
+            scatter(simd, self.sums, NUMBERS * first, steps, &value, high);
+        }
+    }
+}
+
+/// Adds what a voxel gives to cells, in 64 bits.
+fn add(sums: &mut [[i64; NUMBERS]], corner: [i32; 3], place: Place, value: Value) {
+    let (first, high) = lowest(corner, place);
+    for i in 0..8 {
+        let step = [i & 1, i >> 1 & 1, i >> 2];
+        let share = |axis: usize| {
+            if step[axis] == 1 {
+                high[axis]
+            } else {
+                PARTS - high[axis]
+            }
+        };
+        let weight = i64::from(share(0) * share(1) * share(2));
+        let cell = first + step[0] * STEPS[0] + step[1] * STEPS[1] + step[2] * STEPS[2];
+        for (sum, value) in sums[cell].iter_mut().zip(value) {
+            *sum += weight * i64::from(value);
+        }
+    }
+}
+
+/// Adds the near ones of the first `keys` cells of a tile to `cells`. Returns the largest weight of any.
+#[inline(always)]
+fn near(
+    keys: usize,
+    tile: u64,
+    weight: impl Fn(usize) -> i64,
+    sums: impl Fn(usize) -> [i64; NUMBERS],
+    cells: &mut Vec<Cell>,
+) -> u64 {
+    let mut most = 0;
+    for (key, place) in PLACES[..keys].iter().enumerate() {
+        let place = usize::from(*place);
+        let weight = weight(place) as u64;
+        most = most.max(weight);
+        if weight >= NEAR {
+            let [_, sums @ ..] = sums(place);
+            cells.push(Cell {
+                key: tile << (3 * TILE) | key as u64,
+                voxel: false,
+                weight,
+                sums,
+            });
         }
     }
     most
@@ -167,34 +171,24 @@ mod tests {
 
     #[test]
     fn sums_that_leave_32_bits_are_added_in_64() {
-        let (mut narrow, mut wide) = (vec![[0i32; 4]; CELLS], vec![[0i64; 4]; CELLS]);
-        let voxels = |count: usize| std::iter::repeat_n(([35, 40, 48], [i16::MIN, i16::MAX, -7]), count);
-        let cells = |grid: &mut Grid, count: usize, number: usize| {
+        let voxels = |count: usize| {
+            let value = [1, i16::MIN, i16::MAX, -7];
+            std::iter::repeat_n(([35, 40, 48], std::array::from_fn(|i| value[i % 4])), count)
+        };
+        let cells = |count: usize, number: usize| {
             let mut cells = Vec::new();
-            grid.near(0, 3, number, || voxels(count), &mut cells);
+            Grid::new().near(Isa::detect(), 0, 3, number, || voxels(count), &mut cells);
             cells
                 .iter()
                 .map(|cell: &Cell| (cell.key, cell.weight, cell.sums))
                 .collect::<Vec<_>>()
         };
-        for (count, fits) in [(1, true), (39, true), (400, false), (100_000, false)] {
-            let given = sums(&mut narrow, voxels(count), [0; 3], SIDE);
-            assert_eq!(sums(&mut wide, voxels(count), [0; 3], SIDE), given);
-            let [mut a, mut b] = [Vec::new(), Vec::new()];
-            assert_eq!(near(&mut narrow, given, 0, &mut a) < LIGHT, fits, "{count}");
-            near(&mut wide, given, 0, &mut b);
-            let of_cells = |cells: Vec<Cell>| {
-                { cells.iter() }
-                    .map(|cell| (cell.key, cell.weight, cell.sums))
-                    .collect()
-            };
-            let [a, b]: [Vec<_>; 2] = [a, b].map(of_cells);
-            assert_eq!(a == b, fits, "{count}");
-            // A grid takes what fits, and is left without sums.
-            let mut grid = Grid::new();
-            for number in [count, FEW] {
-                assert_eq!(cells(&mut grid, count, number), b, "{count}");
-            }
+        for count in [1, 39, 400, 100_000] {
+            let wide = cells(count, FEW);
+            assert_eq!(cells(count, count), wide, "{count}");
+            let all: i64 = wide.iter().map(|cell| cell.2[0]).sum();
+            let near: u64 = wide.iter().map(|cell| cell.1).sum();
+            assert_eq!(all, near as i64 * i64::from(i16::MIN), "{count}");
         }
     }
 }

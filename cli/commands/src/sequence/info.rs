@@ -17,7 +17,7 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
     let sequence = super::read(path, limits)?;
     let (mut rows, mut groups) = (Vec::new(), Vec::new());
     rows.push(
-        ["group", "frames", "start", "bytes", "whole", "bits per point"]
+        ["group", "frames", "start", "bytes", "whole", "warped", "bits per point"]
             .map(String::from)
             .to_vec(),
     );
@@ -35,6 +35,7 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
         let bytes: u64 = (0..found.len()).map(|at| found.frame_bytes(at)).sum();
         let points: u64 = (0..found.len()).map(|at| found.frame_header(at).points).sum();
         let whole = (0..found.len()).filter(|at| found.is_whole(*at)).count();
+        let warped = (0..found.len()).filter(|at| found.is_warped(*at)).count();
         let start = sequence.time_of(frames.start)?;
         rows.push(vec![
             group.to_string(),
@@ -42,6 +43,7 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
             format!("{start:.3} s"),
             count(bytes),
             whole.to_string(),
+            warped.to_string(),
             format!("{:.4}", bytes as f64 * 8.0 / points.max(1) as f64),
         ]);
         groups.push(json!({
@@ -50,6 +52,7 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
             "bytes": bytes,
             "points": points,
             "whole": whole,
+            "warped": warped,
         }));
     }
     let header = sequence.header();
