@@ -1,5 +1,7 @@
 //! What a previous frame tells of each level (`docs/format.md`, clauses 17.6, 17.7 and 17.10.7).
 
+mod field;
+
 use std::sync::{Arc, OnceLock};
 
 use b2p_kernels::Isa;
@@ -15,6 +17,7 @@ use crate::colour::{self, Ycc};
 use crate::error::{Error, Result};
 use crate::geometry::codec::guide::{Guide, Mode};
 use crate::geometry::{Octree, ones};
+use field::{Block, Cursor, Field, moved};
 
 /// A frame that is predicted: the previous frame and the motion.
 #[derive(Debug, Clone)]
@@ -409,46 +412,6 @@ fn windows<const N: usize>(
     parents.map_init(start, window).unzip()
 }
 
-/// The motion of a level's nodes.
-struct Field<'a> {
-    /// Keys of the blocks.
-    keys: &'a [u64],
-    /// Bits from the key of a node to that of its block.
-    down: u32,
-    blocks: Vec<Block>,
-}
-
-/// The motion of a block at a level.
-#[derive(Debug, Clone, Copy)]
-struct Block {
-    modes: Modes,
-    /// Its vector in voxels of the level, rounded to the nearest, halves up.
-    shift: [i32; 3],
-    /// The same rounded down, and what is left of it, in units of 1/16.
-    low: [i32; 3],
-    part: [i32; 3],
-}
-
-impl Block {
-    /// A block whose vector is in voxels of level `unit`.
-    fn new(modes: Modes, vector: [i16; 3], unit: u8, level: u8) -> Self {
-        let down = u32::from(unit - level);
-        let half = if down == 0 { 0 } else { 1i32 << (down - 1) };
-        let vector = vector.map(i32::from);
-        Block {
-            modes,
-            shift: vector.map(|x| (x + half) >> down),
-            low: vector.map(|x| x >> down),
-            part: vector.map(|x| ((x << 4) >> down) & 15),
-        }
-    }
-
-    /// The same modes without motion.
-    fn stop(&mut self) {
-        (self.shift, self.low, self.part) = ([0; 3], [0; 3], [0; 3]);
-    }
-}
-
 /// The colour of the previous frame between voxels: at a place, less `part` sixteenths of a voxel along each axis. The
 /// mean of the voxels that are there, by their shares.
 fn interpolated(previous: &PreviousLevel, near: &mut Near, at: [i32; 3], part: [i32; 3]) -> Option<Ycc> {
@@ -469,43 +432,4 @@ fn interpolated(previous: &PreviousLevel, near: &mut Near, at: [i32; 3], part: [
         }
     }
     (total > 0).then(|| sums.map(|sum| (2 * sum + total).div_euclid(2 * total) as i16))
-}
-
-impl Field<'_> {
-    /// The same modes without motion.
-    fn stopped(mut self) -> Self {
-        self.blocks.iter_mut().for_each(Block::stop);
-        self
-    }
-
-    /// Finds the blocks of nodes.
-    fn cursor(&self) -> Cursor<'_> {
-        Cursor { field: self, block: 0 }
-    }
-}
-
-/// Finds the blocks of nodes, fast where a node is in the block of the one before.
-struct Cursor<'a> {
-    field: &'a Field<'a>,
-    /// The block found last.
-    block: usize,
-}
-
-impl Cursor<'_> {
-    /// The block of the node with this key.
-    #[inline]
-    fn at(&mut self, key: u64) -> &Block {
-        let Field { keys, down, blocks } = self.field;
-        let key = key >> down;
-        if keys[self.block] != key {
-            self.block = keys.partition_point(|block| *block < key);
-        }
-        &blocks[self.block]
-    }
-}
-
-/// Where the voxel at this place was in the previous frame.
-#[inline]
-fn moved(at: [i32; 3], shift: [i32; 3]) -> [i32; 3] {
-    [at[0] - shift[0], at[1] - shift[1], at[2] - shift[2]]
 }
