@@ -77,6 +77,11 @@ export class Viewer extends EventTarget {
     try {
       await this.#feed(number, await readable(source));
     } catch (error) {
+      if (number === this.#stream) {
+        // The levels that came are shown before the fault.
+        this.#worker.postMessage({ type: "broken", number });
+        await done.catch(() => {});
+      }
       this.#waiting.delete(number);
       throw error;
     }
@@ -185,6 +190,9 @@ export class Viewer extends EventTarget {
         if (message.stream !== this.#stream) break;
         this.#tell("level", message);
         this.draw();
+        break;
+      case "broken":
+        this.#waiting.get(message.stream)?.resolve(null);
         break;
       case "done":
         this.#waiting.get(message.stream)?.resolve(message.level);

@@ -192,6 +192,9 @@ const on = {
   bytes({ number, bytes }) {
     if (number === stream && source) attempt(() => source.push(bytes));
   },
+  broken({ number }) {
+    postMessage({ type: "broken", stream: number });
+  },
   end({ number }) {
     if (number !== stream || !source) return;
     attempt(() => {

@@ -97,6 +97,7 @@ test("a cut download and a damaged file are reported, and the levels that came s
     const page = await show(name);
     await page.until("document.body.dataset.state === 'error'");
     await page.until("Number(document.body.dataset.pictures) > 0");
+    assert.equal(await page.evaluate("document.body.dataset.state"), "error", `${name}: the fault stays`);
     const pixels = await page.evaluate(PIXELS);
     assert.ok(pixels.some((x, i) => i % 4 !== 3 && x !== 255), `${name}: the picture stays`);
   }

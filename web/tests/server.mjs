@@ -35,10 +35,10 @@ export async function serve(streams, { isolated = false, missing = [] } = {}) {
 /** Answers with all bytes. */
 export const whole = (bytes) => (response) => response.end(bytes);
 
-/** Answers with some bytes, and then breaks the connection. */
+/** Answers with some bytes, and then breaks the connection, before a level of them is decoded. */
 export const broken = (bytes, length) => (response) => {
   response.writeHead(200, { "content-length": bytes.length });
-  response.write(bytes.subarray(0, length), () => setTimeout(() => response.destroy(), 200));
+  response.write(bytes.subarray(0, length), () => setTimeout(() => response.destroy(), 50));
 };
 
 /** Answers with some bytes, and with the others when `go` is called. */
