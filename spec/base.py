@@ -19,12 +19,12 @@ def require(condition, clause, what):
 
 def limit(x, most):
     """1.3.2"""
-    return max(-most, min(most, x))
+    return -most if x < -most else most if x > most else x
 
 
 def clamp(x, low, high):
     """1.3.2"""
-    return max(low, min(high, x))
+    return low if x < low else high if x > high else x
 
 
 def quot(a, b):

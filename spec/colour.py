@@ -434,8 +434,8 @@ def filtered(voxels, values, steps, payload):
 
 def response(d, r):
     """5.11.2"""
-    x = min(abs(d) * r >> 12, 4096)
-    return d * (4096 - (x * x >> 12)) >> 12
+    x = abs(d) * r >> 12
+    return d * (4096 - (x * x >> 12)) >> 12 if x < 4096 else 0
 
 
 def filter_pass(voxels, values, steps, weights):
