@@ -20,8 +20,9 @@ install() { # COMMAND PACKAGE
 
 install node nodejs || { echo "skipped: Node cannot be had" && exit 0; }
 web/build.sh || { echo "skipped: the target wasm32-wasip1 cannot be had" && exit 0; }
-# The kernels, but for tests that end in a panic, which ends a module.
-CARGO_TARGET_WASM32_WASIP1_RUSTFLAGS="-C target-feature=+simd128,+bulk-memory" \
+# The kernels, but for tests that end in a panic, which ends a module. Tests are barely optimised, and need more than the
+# usual stack of 1 MiB.
+CARGO_TARGET_WASM32_WASIP1_RUSTFLAGS="-C target-feature=+simd128,+bulk-memory -C link-arg=-zstack-size=8388608" \
     CARGO_TARGET_WASM32_WASIP1_RUNNER="node --no-warnings $PWD/tests/wasi.mjs" \
     cargo test --locked --target wasm32-wasip1 -p b2p-kernels --lib -- \
     --skip map:: --skip a_vector_is_not_loaded_from_fewer_values

@@ -35,7 +35,7 @@ pub use exact::double::add_products;
 pub use exact::requantise::{LIMIT, Requantise};
 pub use exact::{butterflies, coefficients, hidden, jacobi, mixing, scatter, smooth};
 pub use map::{MappedFile, map_file};
-pub use memory::{Zeros, give_back, zeros};
+pub use memory::{Zeros, give_back, keep_freed, zeros};
 pub use simd::{Isa, Scalar, Simd, Simd as Instructions, UnknownIsa, Work};
 pub use sparse::children::{copy_row, window};
 pub use sparse::plan::Plan;

@@ -10,6 +10,10 @@ use bytemuck::Zeroable;
 #[cfg(target_os = "linux")]
 const HUGE: usize = 2 << 20;
 
+/// Blocks that are larger always go back to the system; versions of the library take no more than this.
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+const MOST_KEPT: libc::c_int = 32 << 20;
+
 /// So many zeros, from the system as they are touched: in huge pages where it has them, for every small one costs a
 /// fault. If there is no memory the process ends, as with every other vector: it must not unwind, for reporting that takes
 /// memory, too.
@@ -55,6 +59,19 @@ pub fn give_back() {
     unsafe {
         libc::malloc_trim(0)
     };
+}
+
+/// From now on keeps what is freed for what is reserved next, in one place for all threads: for processes that reserve the
+/// same again and again, such as for frame after frame. To be called before threads start. It does nothing where the
+/// allocator is not that of the GNU C library.
+pub fn keep_freed() {
+    // SAFETY: sets numbers of the allocator, which it guards with a lock.
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    unsafe {
+        libc::mallopt(libc::M_ARENA_MAX, 1);
+        libc::mallopt(libc::M_MMAP_THRESHOLD, MOST_KEPT);
+        libc::mallopt(libc::M_TRIM_THRESHOLD, libc::c_int::MAX);
+    }
 }
 
 /// Asks for huge pages where whole ones fit. It is up to the system to give them.

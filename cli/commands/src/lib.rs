@@ -166,6 +166,9 @@ fn parse() -> Cli {
 }
 
 fn run(cli: &mut Cli) -> Result<()> {
+    if plays(&cli.command) {
+        b2p_kernels::keep_freed();
+    }
     start_threads(cli.threads)?;
     let progress = progress::Progress::new(cli.quiet);
     let limits = cli.limits.limits();
@@ -224,6 +227,18 @@ fn run(cli: &mut Cli) -> Result<()> {
     drop(progress);
     said.say()?;
     manners::remember()
+}
+
+/// Whether the command draws a sequence, whose frames take the same memory one after the other.
+fn plays(command: &Command) -> bool {
+    match command {
+        Command::Render(args) => args
+            .files
+            .is_any(|path| !manners::is_pipe(path) && sequence::is_sequence(path)),
+        #[cfg(feature = "view")]
+        Command::Play(_) => true,
+        _ => false,
+    }
 }
 
 /// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for,

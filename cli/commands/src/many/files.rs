@@ -97,6 +97,11 @@ pub struct Kind<'a> {
 }
 
 impl Files {
+    /// Whether `is` holds for a path that was given.
+    pub fn is_any(&self, is: impl Fn(&Path) -> bool) -> bool {
+        self.paths.iter().any(|path| is(path))
+    }
+
     /// Tells inputs from the output.
     ///
     /// # Errors
