@@ -119,6 +119,10 @@ const BROKEN_PIPE: u8 = 128 + 13;
 pub fn main() -> ExitCode {
     let mut cli = parse();
     manners::set(&cli);
+    // Ctrl-C is awaited by a thread, too.
+    if plays(&cli.command) {
+        b2p_kernels::keep_freed();
+    }
     let usual = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         // Readers of other crates may panic on damaged files, which becomes an error.
@@ -166,9 +170,6 @@ fn parse() -> Cli {
 }
 
 fn run(cli: &mut Cli) -> Result<()> {
-    if plays(&cli.command) {
-        b2p_kernels::keep_freed();
-    }
     start_threads(cli.threads)?;
     let progress = progress::Progress::new(cli.quiet);
     let limits = cli.limits.limits();
