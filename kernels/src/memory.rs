@@ -10,7 +10,7 @@ use bytemuck::Zeroable;
 #[cfg(target_os = "linux")]
 const HUGE: usize = 2 << 20;
 
-/// Blocks that are larger always go back to the system; versions of the library take no more than this.
+/// Blocks that are larger go back to the system.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 const MOST_KEPT: libc::c_int = 32 << 20;
 

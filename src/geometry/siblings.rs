@@ -201,7 +201,9 @@ impl SiblingMap {
                 return;
             }
             for (position, mask) in ones(children).zip(&mut masks) {
-                *mask = row(block.there[parent] >> corner(octant(position)));
+                let there = block.there[parent] >> corner(octant(position));
+                let lines = (0..9).map(|line| (there >> place(3 * line) & 7) << (3 * line));
+                *mask = lines.sum::<u64>() as u32;
             }
         }
     }
@@ -342,18 +344,6 @@ pub const AROUND: usize = place(26) + 1;
 /// Where the voxel at offset `k` of a child's row is in the window, from the first of that row on.
 pub const fn place(k: usize) -> usize {
     k % 3 + 4 * (k / 3 % 3) + 16 * (k / 9)
-}
-
-/// Which of the 27 places of a row are occupied, of the positions of a window from its first place on: bit `k` for
-/// [`place`]`(k)`.
-#[inline(always)]
-fn row(there: u64) -> u32 {
-    // Three of four lines of each of three layers, and three places of four in each line.
-    let layer = |z: usize| {
-        let there = (there >> (16 * z)) as u32;
-        there & 0o7 | there >> 1 & 0o70 | there >> 2 & 0o700
-    };
-    layer(0) | layer(1) << 9 | layer(2) << 18
 }
 
 /// Where the row of a child begins in the window.
