@@ -92,7 +92,7 @@ fn every_target_holds_on_changed_seeds() {
             };
             let runs = match name {
                 "model" => 100,
-                "backends" | "stream" | "render" => 1_000,
+                "backends" | "render" | "scene" | "sequence" | "stream" | "transform" => 1_000,
                 _ => 5_000,
             } * rounds;
             for seed in 0..runs {

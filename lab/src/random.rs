@@ -8,11 +8,13 @@ pub struct Random(u64);
 
 impl Random {
     /// The sequence of `seed`.
+    #[inline]
     pub fn new(seed: u64) -> Self {
         Random(mix(seed.wrapping_add(GOLDEN)))
     }
 
     /// The sequence of `seed` from its draw number `index` on.
+    #[inline]
     pub fn at(seed: u64, index: u64) -> Self {
         let mut random = Random::new(seed);
         random.0 = random.0.wrapping_add(index.wrapping_mul(GOLDEN));
@@ -25,6 +27,7 @@ impl Random {
     }
 
     /// 64 random bits.
+    #[inline]
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(GOLDEN);
         mix(self.0)
@@ -69,6 +72,7 @@ impl Random {
     }
 }
 
+#[inline]
 fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -55,8 +55,8 @@ fn fraction(bits: u64) -> f32 {
 
 /// A number in `[0, 1)` that belongs to a lattice point; the lattice repeats after 2²¹ points.
 pub fn lattice(x: i32, y: i32, z: i32, seed: u32) -> f32 {
-    let packed = [x, y, z].map(|v| u64::from(v as u32 & 0x1f_ffff));
-    let index = packed[0] | packed[1] << 21 | packed[2] << 42;
+    let low = |v: i32| u64::from(v as u32 & 0x1f_ffff);
+    let index = low(x) | low(y) << 21 | low(z) << 42;
     fraction(Random::at(seed.into(), index).bits())
 }
 
