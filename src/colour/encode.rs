@@ -7,7 +7,7 @@ use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::block::Coding;
-use super::filter::{Responses, TERMS, solve, terms, widen};
+use super::filter::{TERMS, neighbourhood, responses, solve, terms, widen};
 use super::importance::Importance;
 use super::model::{BINS, CoefficientContext, Model};
 use super::node::{CoefficientCoder, Quantiser};
@@ -460,14 +460,14 @@ impl Work for Fit<'_> {
             steps,
             truth,
         } = self;
-        let responses = Responses::new(steps);
+        let responses = responses(steps);
         let mut sums = NormalEquations::default();
         let mut windows = map.windows(first);
         for voxel in first..values.len().min(first + FIT_BLOCK) {
             let Some((window, corner)) = windows.next() else {
                 break;
             };
-            let terms = terms(&responses.means(instructions, values, voxel, window, corner));
+            let terms = terms(&responses.means(instructions, neighbourhood(values, voxel, window, corner)));
             for t in 0..3 {
                 let residual = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
                 let x = terms[t].map(|x| f64::from(x) / 4.0);

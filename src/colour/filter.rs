@@ -11,9 +11,10 @@
 //! 1. n of faces, 2. n of edges, 3. n of corners, 4. w of faces, 5. w of edges and corners.
 //!
 //! # Arithmetic
-//! Integers as in clause 5.11.3. Products of a sum and an inverse have 64 bits. Results are clamped as decoded colours.
+//! Integers as in clause 5.11.3. Products of a sum and an inverse have 64 bits, or 32 where that is enough. Results are
+//! clamped as decoded colours.
 
-use b2p_kernels::smooth::{Lanes, Values, responses};
+use b2p_kernels::smooth::{Lanes, Neighbourhood, Responses, Values};
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
@@ -163,20 +164,15 @@ impl Work for FilterBlock<'_> {
             pass,
             out,
         } = self;
-        let kernel = Responses::new(steps);
+        let responses = responses(steps);
         let weights = by_lane(pass);
         let mut windows = map.windows(first);
         for (voxel, out) in (first..).zip(out) {
             let Some((window, corner)) = windows.next() else {
                 return;
             };
-            let means = kernel.means(instructions, values, voxel, window, corner);
-            let mut sums = [0i32; 8];
-            for (weights, means) in weights.iter().zip(&means) {
-                for (sum, (weight, mean)) in sums.iter_mut().zip(weights.iter().zip(means)) {
-                    *sum = sum.wrapping_add(weight.wrapping_mul(*mean));
-                }
-            }
+            let near = neighbourhood(values, voxel, window, corner);
+            let sums = responses.weighted(instructions, near, &weights);
             for t in 0..3 {
                 let sum = sums[t].wrapping_add(sums[4 + t]);
                 out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
@@ -195,7 +191,7 @@ fn by_lane(pass: &Pass) -> [Lanes; 3] {
     weights
 }
 
-/// Values in the layout of [`responses`]: Y, Co, Cg and 0, twice.
+/// Values in the layout of [`Values`]: Y, Co, Cg and 0, twice.
 pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
     values
         .par_iter()
@@ -218,62 +214,41 @@ const CLASSES: [u64; 3] = {
     classes
 };
 
-/// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones.
-pub(super) struct Responses {
-    inverses: Lanes,
+/// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones. Means
+/// are four times those of clause 5.11.3.
+pub(super) fn responses(steps: Steps) -> Responses {
+    let units = steps.units();
+    let inverse = |lane: usize| match (lane % 4, if lane < 4 { 7 } else { 28 }) {
+        (3, _) => 1 << 16,
+        (t, _) if units[t] == 0 => 1 << 16,
+        (t, tenths) => ((1 << 24) / (units[t] * tenths / 10).max(1)).min(1 << 16),
+    };
+    Responses::new(std::array::from_fn(inverse), CLASS_WEIGHTS)
 }
 
-impl Responses {
-    pub fn new(steps: Steps) -> Responses {
-        let units = steps.units();
-        let inverse = |lane: usize| match (lane % 4, if lane < 4 { 7 } else { 28 }) {
-            (3, _) => 1 << 16,
-            (t, _) if units[t] == 0 => 1 << 16,
-            (t, tenths) => ((1 << 24) / (units[t] * tenths / 10).max(1)).min(1 << 16),
-        };
-        Responses {
-            inverses: std::array::from_fn(inverse),
-        }
-    }
-
-    /// Four times the weighted means over all neighbours of a voxel of the narrow responses in lanes 0 to 2, of the wide
-    /// ones in lanes 4 to 6: those of faces, of edges, and of corners. The wide ones of corners count as edges. `corner`
-    /// is where the voxel's row begins in the window.
-    #[inline(always)]
-    pub fn means<I: Instructions>(
-        &self,
-        instructions: I,
-        values: &[Values],
-        voxel: usize,
-        window: &Window,
-        corner: usize,
-    ) -> [Lanes; 3] {
-        let (around, there) = window.voxels();
-        let mut classes = [[0; 8]; 3];
-        let mut counts = 0;
-        for ((sums, class), weight) in classes.iter_mut().zip(CLASSES).zip(CLASS_WEIGHTS) {
-            let places = there & class << corner;
-            *sums = responses(instructions, values, &values[voxel], around, places, &self.inverses);
-            for sum in sums.iter_mut() {
-                *sum *= weight;
-            }
-            counts += weight * places.count_ones() as i32;
-        }
-        let [_, edges, corners] = &mut classes;
-        for (edge, corner) in edges[4..].iter_mut().zip(&mut corners[4..]) {
-            *edge += std::mem::take(corner);
-        }
-        let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
-        for sums in &mut classes {
-            for sum in sums {
-                *sum = ((i64::from(*sum) * inverse) >> 14) as i32;
-            }
-        }
-        classes
+/// A voxel and its neighbours by class. `corner` is where the voxel's row begins in the window.
+#[inline(always)]
+pub(super) fn neighbourhood<'a>(
+    values: &'a [Values],
+    voxel: usize,
+    window: &'a Window,
+    corner: usize,
+) -> Neighbourhood<'a> {
+    let (around, there) = window.voxels();
+    let [faces, edges, corners] = CLASSES;
+    Neighbourhood {
+        values,
+        own: &values[voxel],
+        around,
+        places: [
+            there & faces << corner,
+            there & edges << corner,
+            there & corners << corner,
+        ],
     }
 }
 
-/// The terms of the three channels, of what [`Responses::means`] returns.
+/// The terms of the three channels, of what [`Responses::means`] gives.
 #[cfg(feature = "encoder")]
 pub(super) fn terms([faces, edges, corners]: &[Lanes; 3]) -> Terms {
     std::array::from_fn(|t| [faces[t], edges[t], corners[t], faces[4 + t], edges[4 + t]])
