@@ -142,8 +142,9 @@ impl Responses {
             edges.store(&mut sums[1][at..]);
             corners.store(&mut sums[2][at..]);
         }
-        for lane in 4..8 {
-            sums[1][lane] += std::mem::take(&mut sums[2][lane]);
+        let [_, edges, corners] = &mut sums;
+        for (edge, corner) in edges[4..].iter_mut().zip(&mut corners[4..]) {
+            *edge += std::mem::take(corner);
         }
         for sum in sums.as_flattened_mut() {
             *sum = ((i64::from(*sum) * share) >> 14) as i32;
