@@ -57,7 +57,7 @@ impl Responses {
     /// If a neighbour lies beyond the values.
     #[inline(always)]
     pub fn means<S: Simd>(&self, simd: S, near: Neighbourhood<'_>) -> [Lanes; 3] {
-        self.means_narrow(simd.narrow(), near)
+        self.exact_means(simd.narrow(), near)
     }
 
     /// The sum of the means of the three classes, each times its `factors`. It wraps.
@@ -70,26 +70,10 @@ impl Responses {
     }
 
     #[inline(always)]
-    fn means_narrow<S: Simd>(&self, simd: S, near: Neighbourhood<'_>) -> [Lanes; 3] {
-        if !self.small {
-            return self.large_means(simd, near);
-        }
-        let share = self.share(near);
-        let mut means = [[0; 8]; 3];
-        for at in (0..8).step_by(S::LANES) {
-            let [faces, edges, corners] = self.small_means(simd, near, share, at);
-            faces.store(&mut means[0][at..]);
-            edges.store(&mut means[1][at..]);
-            corners.store(&mut means[2][at..]);
-        }
-        means
-    }
-
-    #[inline(always)]
     fn weighted_narrow<S: Simd>(&self, simd: S, near: Neighbourhood<'_>, factors: &[Lanes; 3]) -> Lanes {
         let mut total = [0i32; 8];
         if !self.small {
-            let means = self.large_means(simd, near);
+            let means = self.exact_means(simd, near);
             for lane in 0..8 {
                 for class in 0..3 {
                     total[lane] = total[lane].wrapping_add(factors[class][lane].wrapping_mul(means[class][lane]));
@@ -131,9 +115,9 @@ impl Responses {
         ]
     }
 
-    /// The means, whose products have 64 bits.
+    /// The means, by products of 64 bits.
     #[inline(always)]
-    fn large_means<S: Simd>(&self, simd: S, near: Neighbourhood<'_>) -> [Lanes; 3] {
+    fn exact_means<S: Simd>(&self, simd: S, near: Neighbourhood<'_>) -> [Lanes; 3] {
         let share = i64::from(self.share(near));
         let mut sums = [[0; 8]; 3];
         for at in (0..8).step_by(S::LANES) {
@@ -219,6 +203,38 @@ mod tests {
         fn run<S: Simd>(self, simd: S) -> Self::Output {
             let means = self.responses.means(simd, self.near);
             (means, self.responses.weighted(simd, self.near, self.factors))
+        }
+    }
+
+    #[test]
+    fn the_largest_responses_fit_32_bits() {
+        let values = [[-16384; 8], [16384; 8]];
+        let responses = Responses::new([Responses::SMALL; 8], [20, 12, 7]);
+        for places in [
+            [!0, 0, 0],
+            [0, !0, 0],
+            [0, 0, !0],
+            [1, 0, 0],
+            [0, 0, 1],
+            [63, 4095 << 6, 255 << 18],
+        ] {
+            let (around, factors) = ([1; 64], [[127; 8]; 3]);
+            let near = Neighbourhood {
+                values: &values,
+                own: &values[0],
+                around: &around,
+                places,
+            };
+            let means = plain(&responses, near);
+            let weighted = std::array::from_fn(|lane| (0..3).map(|class| 127 * means[class][lane]).sum());
+            for isa in Isa::available() {
+                let work = Run {
+                    responses: &responses,
+                    near,
+                    factors: &factors,
+                };
+                assert_eq!(isa.run(work), (means, weighted), "{isa}");
+            }
         }
     }
 
